@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from impc.arrays import Array
 from impc.control.halfspaces import seen_directions, supports
+from impc.control.terminal_set import TerminalSet
 from impc.model.weights import Weights, normalised
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.control.terminal_set import TerminalSet
 
 
 def cholesky_parameters(weights: Weights) -> Array:

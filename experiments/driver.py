@@ -11,24 +11,21 @@ from __future__ import annotations
 import functools
 import json
 import multiprocessing
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy.signal
 from tqdm import tqdm
 
+from impc.arrays import Array
 from impc.control.closed_loop import simulate
+from impc.control.controller import Controller
 from impc.control.feasibility import require_complete
 from impc.control.simulation import scenario
 from impc.model.recordings import Recording
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from impc.arrays import Array
-    from impc.control.controller import Controller
 
 __all__ = ["Row", "each", "first_order_noise", "kept_rows", "noisy", "with_noise"]
 

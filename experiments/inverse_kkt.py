@@ -26,12 +26,13 @@ commands (statsmodels; Durbin and Koopman 2012, chapter 4). This is a form of in
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 import scipy.optimize
+from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.errors import DataError
@@ -41,17 +42,10 @@ from impc.inverse.problem import Problem
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
 from impc.inverse.solution_set import natural_coordinates, split_blocks
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, normalised
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
-
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
-    from impc.model.recordings import Recording
 
 # An input within this share of its bound counts as at the bound.
 _AT_BOUND = 1e-2

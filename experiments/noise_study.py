@@ -22,11 +22,14 @@ from experiments.benchmarks.workloads import seat
 from experiments.driver import Row, kept_rows, noisy
 from experiments.inverse_kkt import INVERSE_KKT
 from experiments.summary import markdown
+from impc.arrays import Array
 from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
+from impc.control.simulation import Scenario
+from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
-from impc.inverse.problem import controller_for
+from impc.inverse.problem import Problem, controller_for
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.recordings import Recording
 from impc.reporting.style import (
@@ -46,11 +49,6 @@ from impc.studies.fit.settings import FitSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from impc.arrays import Array
-    from impc.control.simulation import Scenario
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
 
 __all__ = ["COMPARED", "study_cell"]
 

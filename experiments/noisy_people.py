@@ -10,14 +10,15 @@ limit some subjects on the seat fall.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import control
 import numpy as np
 
 import plants
 from experiments.benchmarks.workloads import seat
+from impc.arrays import Array
 from impc.assess.variance_accounted_for import vaf
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
@@ -30,11 +31,6 @@ from impc.model.structure import Structure
 from impc.model.weights import Weights
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.simulation import simulate_person
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.arrays import Array
 
 __all__ = ["BODIES", "NOISES", "Recorded", "Subject", "recorded", "subject"]
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from experiments.noisy_people import Recorded, Subject
+from impc.arrays import Array
 from impc.assess.covariance import gain_covariance
 from impc.inverse.methods import fit
-from impc.output_feedback.fit import fit_output_feedback
-from impc.output_feedback.intervals import IDENTIFIED, fallen, person_covariance
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
+from impc.output_feedback.intervals import IDENTIFIED, PersonCovariance, fallen, person_covariance
+from impc.output_feedback.observer import Observer
 from impc.output_feedback.simulation import simulate_person
-
-if TYPE_CHECKING:
-    from experiments.noisy_people import Recorded, Subject
-    from impc.arrays import Array
-    from impc.output_feedback.fit import OutputFeedbackFit
-    from impc.output_feedback.intervals import PersonCovariance
-    from impc.output_feedback.observer import Observer
 
 __all__ = ["Score", "above_truth", "blind", "passed_over", "score"]
 

@@ -13,8 +13,8 @@ import argparse
 import functools
 import itertools
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,9 +24,6 @@ from experiments.noisy_people_score import Pairs, Score, passed_over, score
 from experiments.summary import clustered, markdown
 from impc.assess.covariance import TWO_SIDED
 from impc.errors import ImpcError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 __all__ = ["HEAD", "cells"]
 

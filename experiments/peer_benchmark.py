@@ -13,22 +13,19 @@ import argparse
 import functools
 import itertools
 import time
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from experiments.driver import each
-from experiments.peer_systems import SYSTEMS
+from experiments.peer_systems import SYSTEMS, PeerSystem
 from experiments.summary import counted, markdown
+from impc.arrays import Array
 from impc.errors import ImpcError
+from impc.nonlinear.closed_loop import OptimalRecording
+from impc.nonlinear.combinations import Combination
 from impc.nonlinear.fit import fit_optimal_control
 from impc.nonlinear.plan import SOLVERS
-
-if TYPE_CHECKING:
-    from experiments.peer_systems import PeerSystem
-    from impc.arrays import Array
-    from impc.nonlinear.closed_loop import OptimalRecording
-    from impc.nonlinear.combinations import Combination
 
 __all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from"]
 

@@ -12,7 +12,7 @@ experiments/planning.md.
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
@@ -20,18 +20,13 @@ import plants
 from experiments.driver import each
 from experiments.printed_intervals import carts
 from experiments.summary import markdown
+from impc.arrays import Array
 from impc.control.controller import Controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.weights import Weights
-from impc.studies.plan.designs import Design, Person, designs, try_design
+from impc.studies.plan.designs import Design, Person, Perturbation, designs, try_design
 from impc.studies.plan.study import simulated_fits
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.arrays import Array
-    from impc.studies.plan.designs import Perturbation
 
 __all__ = ["cart", "compare", "seat"]
 

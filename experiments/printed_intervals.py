@@ -15,18 +15,20 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import control
 import numpy as np
 
 from experiments.driver import each, with_noise
 from experiments.summary import markdown
+from impc.arrays import Array
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import gain_estimate
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
+from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -34,10 +36,6 @@ from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.inverse.estimates import Estimate
 
 __all__ = [
     "Scores",

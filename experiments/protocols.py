@@ -12,13 +12,10 @@ the experiment at that amplitude, reduced by a step after each loss, until two i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from impc.errors import InputError, SolverError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 @dataclass(frozen=True)

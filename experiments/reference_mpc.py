@@ -6,21 +6,16 @@ This plain implementation is the reference for the fast one in `impc.control.clo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array
 from impc.control.body_steps import next_state
 from impc.control.casadi_controller import EXCEEDED, MpcSolver
 from impc.control.controller import Controller
 from impc.control.named_solver import excluded_row, silent
-from impc.control.simulation import Simulation, Status
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from impc.control.simulation import Scenario
+from impc.control.simulation import Scenario, Simulation, Status
 
 
 @dataclass(frozen=True)

@@ -9,18 +9,15 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
-from typing import TYPE_CHECKING
 
 from experiments.driver import each
 from experiments.search_problems import Known, random_problem, stick_problem
 from experiments.summary import counted
 from impc.errors import ImpcError
+from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import recorded_size
 from impc.inverse.search import refine_gain
-
-if TYPE_CHECKING:
-    from impc.inverse.estimates import Estimate
 
 __all__ = ["is_right", "warned"]
 

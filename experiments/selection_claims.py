@@ -11,18 +11,19 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
 
 import plants
 from experiments.summary import markdown
-from impc.arrays import percentiles
+from impc.arrays import Array, percentiles
 from impc.studies.selection.analysis import bootstrap_subset
 from impc.studies.selection.estimation import estimate, free_indices
 from impc.studies.selection.fisher import (
+    Information,
     Selection,
     fisher_information,
     largest_subsets,
@@ -30,15 +31,8 @@ from impc.studies.selection.fisher import (
     sweep,
 )
 from impc.studies.selection.lasso import lasso_objective, lasso_of_size
-from impc.studies.selection.model import Trial, normalised
+from impc.studies.selection.model import ParametricModel, Trial, normalised
 from impc.studies.selection.model_source import model_source
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from impc.arrays import Array
-    from impc.studies.selection.fisher import Information
-    from impc.studies.selection.model import ParametricModel
 
 __all__ = [
     "FIM_SUBSET",

@@ -12,23 +12,21 @@ from __future__ import annotations
 
 import argparse
 import functools
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from experiments.benchmarks.workloads import seat
 from experiments.driver import each, noisy
 from experiments.summary import markdown
+from impc.arrays import Array, IntArray
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import covariance_intervals, follows_command, gain_estimate
 from impc.inverse.noisy_fit import fit_controller
+from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-
-if TYPE_CHECKING:
-    from impc.arrays import Array, IntArray
-    from impc.model.plant import Plant
 
 __all__ = ["Subject", "noisy_recordings", "simulated_subject"]
 

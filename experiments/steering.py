@@ -19,8 +19,8 @@ import sys
 import tarfile
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import control
 import numpy as np
@@ -36,9 +36,6 @@ from impc.inverse.problem import controller_for
 from impc.jit import njit
 from impc.output_feedback.simulation import simulate_person
 from plants.actuation import pade_delay
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 TRAINED, HORIZON, FAR = 3, 20, 1e3
 #: Delay (s), lag (s) and learning rate (1/s) at which searches start.

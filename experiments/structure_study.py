@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import argparse
 import functools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,11 +24,13 @@ import plants
 from experiments.driver import Row, kept_rows, with_noise
 from experiments.printed_intervals import carts
 from experiments.summary import clustered, markdown
+from impc.arrays import Array
 from impc.assess.structured_weights import Tangent, tangent, weight_covariance
 from impc.assess.structures import structure_test
 from impc.assess.weight_profiles import WeightProfiles
 from impc.control.controller import Controller
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import Problem
 from impc.inverse.structured import fit_structure, search_from
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -35,12 +38,6 @@ from impc.model.structure import Structure
 from impc.model.weights import Weights
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from impc.arrays import Array
-    from impc.inverse.problem import Problem
 
 __all__ = ["Person", "Score", "cart_person", "score", "seat_person"]
 

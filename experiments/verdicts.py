@@ -16,24 +16,22 @@ import itertools
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 import impc
 from experiments.coverage import cart
 from experiments.driver import each
+from impc.arrays import Array
 from impc.checking import replace
 from impc.levels import Level
 from impc.model.riccati import solve_lqr
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.facts import decided, named_gains
+from impc.studies.fit.result import FitResult
 from impc.studies.fit.subject import fit_recordings
 from impc.studies.fit.verdict import FALLEN, GAIN, RULES, WEIGHTS
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.studies.fit.result import FitResult
 
 _LIMIT, _HORIZON, _SAMPLES, _TRIALS = 1.0, 10, 900, 2
 _WEIGHTS = np.array([[4.0, 0.8], [0.8, 1.0]])

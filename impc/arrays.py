@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numbers
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.errors import DataError, InputError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 #: Array of float64; docstrings give its shape.
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]

@@ -7,12 +7,9 @@ worker processes can show them without parsing.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from typing import Self
+from typing import Self
 
 # Longest message; longer names and values are shortened in the middle.
 _LONGEST = 600

@@ -9,14 +9,12 @@ from __future__ import annotations
 import importlib.abc
 import os
 import sys
+from collections.abc import Iterator, Sequence
 from contextlib import chdir, contextmanager, nullcontext
+from importlib.machinery import ModuleSpec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from importlib.machinery import ModuleSpec
-    from types import ModuleType
+from types import ModuleType
+from typing import Any
 
 #: Options with which IPOPT prints nothing and reads no file. With ipopt.opt it could overwrite any
 #: file, or load a library as its linear solver.

@@ -6,15 +6,11 @@ a man, and the height and breadth of the seat are chosen.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from plants._checks import Array
-    from plants.seated_parameters import SeatedBalanceParameters
+from plants._checks import Array
+from plants.seated_parameters import SeatedBalanceParameters
 
 # Seat above its pivot, half its breadth, and size of the mark of the pivot, m.
 _SEAT, _BREADTH, _MARK = 0.05, 0.25, 0.06

@@ -14,14 +14,10 @@ here it is the torque.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
 from plants._checks import Array, finite_number, whole_number
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _PERIOD = 3**5 - 1
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from experiments.benchmarks.memory import peak_megabytes
@@ -14,14 +12,12 @@ from experiments.benchmarks.workloads import example, seat
 from experiments.simulated_subjects import noisy_recordings
 from impc.arrays import frozen
 from impc.checking import replace
+from impc.inverse.estimates import Estimate
 from impc.inverse.search import refine_gain
 from impc.inverse.table31 import inverse_mpc, inverse_mpc_reduced, starting_weights
 from impc.model.riccati import solve_lqr
 from impc.model.weights import weight_error
 from impc.studies.fit.first import FitProgress, first_fits
-
-if TYPE_CHECKING:
-    from impc.inverse.estimates import Estimate
 
 __all__ = ["fit_rows"]
 

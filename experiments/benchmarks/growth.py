@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from experiments.benchmarks.table import Row
 from experiments.benchmarks.timing import Timing, side_by_side
-from experiments.benchmarks.workloads import chain_of_masses, seat, with_horizon
+from experiments.benchmarks.workloads import Workload, chain_of_masses, seat, with_horizon
 from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from experiments.benchmarks.workloads import Workload
 
 __all__ = ["growth_rows"]
 

@@ -6,25 +6,20 @@ These rows only, in a minute: python -m experiments.benchmarks.likelihood
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import seat
-from experiments.noisy_people import recorded, subject
+from experiments.noisy_people import Subject, recorded, subject
 from impc.checking import replace
 from impc.inverse.laws import GainLaw
+from impc.inverse.problem import Problem
 from impc.inverse.unknowns import Point, Unknowns, linear_at
 from impc.output_feedback.unknowns import NoisyUnknowns, Request, gain_space
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from experiments.noisy_people import Subject
-    from impc.inverse.problem import Problem
 
 __all__ = ["likelihood_rows"]
 

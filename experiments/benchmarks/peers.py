@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import cvxpy as cp
 import numpy as np
 import scipy.optimize
 
+from experiments.benchmarks.workloads import Workload
 from experiments.certificates import weights_from_parameters
+from impc.arrays import Array
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
-
-if TYPE_CHECKING:
-    from experiments.benchmarks.workloads import Workload
-    from impc.arrays import Array
 
 __all__ = ["casadi_fit", "casadi_loop", "cvxpy_fit"]
 

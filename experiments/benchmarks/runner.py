@@ -6,9 +6,10 @@ import importlib.util
 import tempfile
 import time
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,13 +20,8 @@ from impc.reporting.writer import owned
 from impc.studies.cache import Cache
 from impc.studies.cohort.study import Study, Unit
 from impc.studies.cohort.tasks import FitTask, Store, fit_unit, run_study
-from impc.studies.pool import Task, processes, run
+from impc.studies.pool import Answer, Pool, Task, processes, run
 from impc.studies.scheduler import Cluster, connected
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.studies.pool import Answer, Pool
 
 __all__ = ["empty", "runner_rows"]
 

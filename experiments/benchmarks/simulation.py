@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from experiments.benchmarks.peers import casadi_loop
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
-from experiments.benchmarks.workloads import seat
+from experiments.benchmarks.workloads import Workload, seat
 from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.model.plant import Plant
 from plants.seated_subject import seated_balance_for
-
-if TYPE_CHECKING:
-    from experiments.benchmarks.workloads import Workload
 
 __all__ = ["simulation_rows"]
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -11,19 +11,15 @@ import numpy as np
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import example, seat
+from impc.arrays import Array
 from impc.checking import replace
 from impc.control.closed_loop import simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.loop_function import closed_loop_function
 from impc.control.named_solver import COMPILED, SOLVERS
+from impc.inverse.estimates import Estimate
 from impc.inverse.table31 import inverse_mpc_reduced
 from impc.model.weights import weight_error
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.arrays import Array
-    from impc.inverse.estimates import Estimate
 
 __all__ = ["solver_rows"]
 

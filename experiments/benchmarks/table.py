@@ -6,15 +6,12 @@ import json
 import os
 import platform
 from importlib.metadata import version
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
+from experiments.benchmarks.timing import Timing
 from experiments.summary import markdown
 from impc.reporting.writer import write_files
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from experiments.benchmarks.timing import Timing
 
 __all__ = ["Row", "compare", "write_tables"]
 

@@ -9,22 +9,18 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
 
 from experiments.certificates import cholesky_parameters, weights_from_parameters
+from impc.arrays import Array
+from impc.inverse.problem import Problem
 from impc.inverse.proximal_search import weight_jacobian
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.table31 import CONDITION_WEIGHT, closed_loop_residual, inverse_mpc
 from impc.model.riccati import solve_lqr
-from impc.model.weights import condition_number
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.inverse.problem import Problem
-    from impc.model.weights import Weights
+from impc.model.weights import Weights, condition_number
 
 __all__ = ["Route", "prox_linear", "smooth_surrogate"]
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import control
 import numpy as np
@@ -20,9 +20,6 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 __all__ = ["Workload", "chain_of_masses", "example", "seat", "with_horizon"]
 

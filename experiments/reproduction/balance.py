@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.reproduction.evidence import table
+from experiments.reproduction.evidence import Evidence, table
 from impc.studies.reliability.icc import icc
 from impc.studies.reliability.measures import band_energy
 from plants.ternary import ternary_sequence
-
-if TYPE_CHECKING:
-    from experiments.reproduction.evidence import Evidence
 
 __all__ = ["balance_values"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +13,15 @@ from experiments.certificates import (
     weights_from_parameters,
 )
 from experiments.reference_mpc import simulate_mpc
+from experiments.reproduction.evidence import Evidence
+from impc.arrays import Array
 from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.control.terminal_set import maximal_invariant_set
 from impc.errors import InputError
+from impc.inverse.estimates import Estimate
 from impc.inverse.problem import Problem
 from impc.inverse.table31 import inverse_mpc, table_3_1
 from impc.model.bounds import Bounds
@@ -28,11 +31,6 @@ from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 from impc.studies.example.cases import BOUND, CASES, HORIZON, STEPS
 from plants import yalmip_example
-
-if TYPE_CHECKING:
-    from experiments.reproduction.evidence import Evidence
-    from impc.arrays import Array
-    from impc.inverse.estimates import Estimate
 
 __all__ = ["controller_values", "example_values"]
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import control
 import numpy as np
 
+from experiments.reproduction.evidence import Evidence
 from impc.assess.variance_accounted_for import vaf
 from impc.inverse.inverse_lqr import inverse_lqr_lmi
 from impc.model.plant import Plant
 from plants.actuation import delayed_muscle
 from plants.seated_balance import continuous_seated_balance_plant
 from plants.seated_parameters import SeatedBalanceParameters
-
-if TYPE_CHECKING:
-    from experiments.reproduction.evidence import Evidence
 
 __all__ = ["seat_values"]
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 import scipy.linalg
 
 import plants
-from experiments.reproduction.evidence import table
+from experiments.reproduction.evidence import Evidence, table
 from experiments.selection_claims import (
     FIM_SUBSET,
     exhaustive,
@@ -18,18 +18,12 @@ from experiments.selection_claims import (
     nominal_information,
     search_times,
 )
-from impc.arrays import frozen
+from impc.arrays import Array, frozen
 from impc.checking import replace
 from impc.studies.selection.estimation import estimate, free_indices, pooled_vaf
-from impc.studies.selection.fisher import fisher_information, largest_subsets
+from impc.studies.selection.fisher import Information, fisher_information, largest_subsets
 from impc.studies.selection.lasso import lasso_of_size
-from impc.studies.selection.model import Trial, normalised, physical, sensitivity
-
-if TYPE_CHECKING:
-    from experiments.reproduction.evidence import Evidence
-    from impc.arrays import Array
-    from impc.studies.selection.fisher import Information
-    from impc.studies.selection.model import ParametricModel
+from impc.studies.selection.model import ParametricModel, Trial, normalised, physical, sensitivity
 
 __all__ = ["appendix_values", "key_values", "kronecker_sensitivity", "sensitive_values"]
 

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import tomlkit
 
+from impc.app.subject import Subject
+from impc.arrays import Array
 from impc.errors import InputError
 from impc.files.configuration import FILL_IN, SignalTable
 from impc.files.draft import guess_of, questions
 from impc.files.plant_sources import UNCERTAINTY
 from impc.files.reading import unit_faults
+from impc.files.table import Table
 from impc.files.units import si_unit
+from impc.model.plant import Plant
 from impc.reporting.shown_units import signal_name
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from impc.app.subject import Subject
-    from impc.arrays import Array
-    from impc.files.table import Table
-    from impc.model.plant import Plant
 
 Changes = dict[tuple[str, ...], Any]  # new value by TOML path; None removes
 CLOCK = "time"

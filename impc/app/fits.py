@@ -14,19 +14,17 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from impc.cli.ending import ExitStatus
 from impc.errors import OutputError
 from impc.jit import cache_home
 from impc.reporting.writer import owned
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 # Seconds between two attempts to lock the folder.
 _AGAIN = 0.5

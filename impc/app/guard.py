@@ -10,12 +10,9 @@ from __future__ import annotations
 import hmac
 import secrets
 from http.cookies import SimpleCookie
-from typing import TYPE_CHECKING
 
 from starlette.responses import PlainTextResponse, RedirectResponse
-
-if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 _HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import functools
 import shlex
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
-from starlette.responses import HTMLResponse, RedirectResponse
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from impc.app.subject import Subject, folder_below, near
 from impc.errors import InputError
 from impc.files.formats import FORMATS
 from impc.levels import Level
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from starlette.requests import Request
-    from starlette.responses import Response
 
 STEPS = {"recordings": "Recordings", "signals": "Signals", "body": "Body and limit", "fit": "Fit",
          "results": "Results", "compare": "Compare"}  # fmt: skip

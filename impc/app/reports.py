@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
+from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
+from impc.app.fits import Fit
 from impc.app.page import back, page, subject_of
-from impc.app.subject import RESULTS
+from impc.app.subject import RESULTS, Subject
 from impc.cli.plant import CONFIGURATION
 from impc.errors import ImpcError
 from impc.files.configuration import toml_content
 from impc.reporting.rendering import report_script_hashes
 from impc.reporting.writer import written
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from starlette.requests import Request
-
-    from impc.app.fits import Fit
-    from impc.app.subject import Subject
 
 # A report may come from someone else: it runs the scripts of impc's pages and no others, and is no
 # page of this server.

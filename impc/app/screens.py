@@ -7,9 +7,9 @@ import secrets
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
 from impc.app import answers
@@ -22,9 +22,6 @@ from impc.files.draft import draft
 from impc.files.formats import FORMATS
 from impc.files.table import OTHER_SHEET
 from impc.reporting.shown_units import signal_name
-
-if TYPE_CHECKING:
-    from starlette.requests import Request
 
 
 def recordings(request: Request) -> Response:

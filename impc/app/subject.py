@@ -6,29 +6,30 @@ import contextlib
 import functools
 import os
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from impc.cli.plant import KNOWN, find_plant, subject_plant
 from impc.errors import ImpcError, InputError
-from impc.files.checks import fault
-from impc.files.configuration import FILL_IN, SubjectTable, configuration, converted, toml_content
+from impc.files.checks import Notice, fault
+from impc.files.configuration import (
+    FILL_IN,
+    Configuration,
+    SubjectTable,
+    configuration,
+    converted,
+    toml_content,
+)
 from impc.files.disk import write_whole
 from impc.files.draft import drafted
 from impc.files.edited import edited
 from impc.files.formats import FORMATS, read_table
-from impc.files.plant_sources import make_plant
+from impc.files.plant_sources import PlantSource, make_plant
 from impc.files.reading import examine
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from impc.files.checks import Notice
-    from impc.files.configuration import Configuration
-    from impc.files.plant_sources import PlantSource
-    from impc.files.table import Table
-    from impc.model.plant import Plant
+from impc.files.table import Table
+from impc.model.plant import Plant
 
 CONFIG, RESULTS, _FIT = "subject.toml", "results", "fit-"
 _FINISHED = "result.json"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
+from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
@@ -15,9 +15,6 @@ from impc.app import reports, screens
 from impc.app.fits import Fits
 from impc.app.page import posted, refused
 from impc.errors import ImpcError
-
-if TYPE_CHECKING:
-    from starlette.requests import Request
 
 _REPORTING = Path(impc.reporting.__file__).parent
 _STATIC = {path.name: path for path in (

@@ -7,17 +7,13 @@ The clock of a column is a rising column named as one: in the same struct or gro
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy
 
+from impc.arrays import Array, BoolArray
 from impc.errors import DataError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.arrays import Array, BoolArray
 
 _WORDS = {
     *("time", "t", "zeit", "temps", "tiempo", "tempo", "tijd", "tid", "uhrzeit", "timestamp"),

@@ -21,15 +21,12 @@ natural frequency of 0.5 Hz).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import scipy
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.arrays import Array, IntArray
+from impc.arrays import Array, IntArray
 
 _PAST, _PAST_ROWS = 6, 8  # lags in the tests of offset and drift, and of shifted rows
 _KNOWN = 3  # effects that the plant alone determines: no controller reacts earlier

@@ -12,17 +12,14 @@ import datetime
 import functools
 import re
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.errors import DataError
 from impc.files.alignment import unwrapped
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from impc.arrays import Array
 
 #: Kinds of a cell.
 EMPTY, NUMBER, WORD = 0, 1, 2

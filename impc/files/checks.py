@@ -8,20 +8,15 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.errors import DataError, FallError, one_line
+from impc.arrays import Array, BoolArray, IntArray
+from impc.errors import DataError, FallError, ImpcError, one_line
+from impc.files.units import Unit
 from impc.levels import Level
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.arrays import Array, BoolArray, IntArray
-    from impc.errors import ImpcError
-    from impc.files.units import Unit
 
 #: First words of the message about a fall.
 FELL = "the subject fell"

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
+from impc.arrays import Array, IntArray
 from impc.checking import replace
 from impc.errors import DataError, InputError, blamed
 from impc.files.alignment import GAP, named_clock, rising, usual_step
 from impc.files.checks import missing_code
+from impc.files.configuration import RecordingTable
+from impc.files.table import Table
 from impc.files.units import si_unit
-
-if TYPE_CHECKING:
-    from impc.arrays import Array, IntArray
-    from impc.files.configuration import RecordingTable
-    from impc.files.table import Table
 
 # Deviation from a uniform clock, in periods, that is reported and makes values be interpolated.
 _JITTER = 0.01

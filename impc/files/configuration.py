@@ -13,8 +13,9 @@ import re
 import sys
 import tomllib
 import warnings
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path, PureWindowsPath
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_type_hints
 
 import msgspec
 
@@ -22,9 +23,6 @@ from impc.checking import checked
 from impc.errors import InputError, blamed, brief
 from impc.files.disk import require_readable
 from impc.files.units import si_unit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
 
 #: Placeholder that `impc inspect` writes for an unknown unit; the user has to replace it.
 FILL_IN = "?"

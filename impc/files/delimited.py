@@ -11,21 +11,26 @@ import csv
 import io
 import itertools
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from impc.checking import replace
 from impc.errors import DataError
 from impc.files.cells import NUMBER, WORD, Column, certain, kind_of
 from impc.files.disk import LARGEST
-from impc.files.layout import HEAD, Row, extent, first_block, table_of, written_heading
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from impc.files.layout import Block, Extent
-    from impc.files.table import Table
+from impc.files.layout import (
+    HEAD,
+    Block,
+    Extent,
+    Row,
+    extent,
+    first_block,
+    table_of,
+    written_heading,
+)
+from impc.files.table import Table
 
 _DELIMITERS = "\t;,| \n"  # the last: a single column
 # Texts for a missing number that pandas takes for one; others are recognised cell by cell.

@@ -16,20 +16,17 @@ import platform
 import sys
 import sysconfig
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from impc.errors import DataError
 from impc.files.disk import require_ordinary
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from types import ModuleType
 
 # This package's own modules; `versions` covers them.
 _OURS = ("impc", "plants")

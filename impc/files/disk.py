@@ -6,12 +6,10 @@ import errno
 import json
 import os
 import stat
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from impc.errors import DataError, ImpcError, OutputError, brief
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 #: Largest file in bytes, and largest arrays in memory: an hour of 16 channels at 2 kHz.
 LARGEST = 1_000_000_000

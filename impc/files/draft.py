@@ -5,29 +5,23 @@ from __future__ import annotations
 import difflib
 import json
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import InputError
 from impc.files.alignment import named_clock, pulse, rising, usual_step
 from impc.files.checks import changes_only, missing_code, straight_lines
 from impc.files.clock import counts_days, read_clock, rejected_clocks
 from impc.files.configuration import FILL_IN, RecordingTable
-from impc.files.plant_sources import OWN, make_plant
-from impc.files.table import in_columns
+from impc.files.plant_sources import OWN, PlantSource, make_plant
+from impc.files.table import Table, in_columns
 from impc.files.units import is_unit, si_unit
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.arrays import Array
-    from impc.files.plant_sources import PlantSource
-    from impc.files.table import Table
-    from impc.model.plant import Plant
+from impc.model.plant import Plant
 
 # Units tried for a clock without unit, with steps per second: the first in which steps are shorter
 # than `_SLOWEST` s, the longest of any movement recording.

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import re
 import tomllib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from impc.errors import InputError
 from impc.extras import optional
 from impc.files.configuration import toml_content
 from impc.files.draft import ON_VALUE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
 
 _TEXT = "configuration"
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 import os
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from impc.checking import checked
 from impc.errors import DataError, ImpcError, InputError, OutputError
@@ -17,11 +17,7 @@ from impc.files.disk import LARGEST, damaged, require_readable, unwritable
 from impc.files.matlab import HDF5_SIGNATURE, encode_matlab
 from impc.files.recorders import encode_c3d, encode_tdms
 from impc.files.spreadsheet import encode_workbook
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.files.table import Table
+from impc.files.table import Table
 
 
 @dataclass(frozen=True)

@@ -9,22 +9,17 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, count
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from impc.errors import DataError
-from impc.files.cells import EMPTY, NUMBER, WORD, require_no_thousands
-from impc.files.table import make_table
+from impc.files.cells import EMPTY, NUMBER, WORD, Column, require_no_thousands
+from impc.files.table import Table, make_table
 from impc.files.units import is_unit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from impc.files.cells import Column
-    from impc.files.table import Table
 
 #: Rows among which the first row of numbers must be.
 HEAD = 100

@@ -12,21 +12,17 @@ import io
 import math
 import re
 import warnings
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
 
+from impc.arrays import Array
 from impc.errors import DataError, OutputError
-from impc.files.table import make_table
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.files.table import Table
+from impc.files.table import Table, make_table
 
 #: First bytes of an HDF5 file.
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"

@@ -16,27 +16,22 @@ import inspect
 import os
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
-from impc.arrays import finite_array
+from impc.arrays import Array, finite_array
 from impc.checking import checked, replace
 from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.files.configuration import FILL_IN
 from impc.files.saved_plant import SAVED, read_matrices, state_space
 from impc.model.plant import Plant
 from impc.model.plant_family import DELAY, LIMIT, PlantFamily, plant_differential
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from impc.arrays import Array
 
 #: Arguments of a plant that are measured for every subject.
 OWN = ("mass", "height")

@@ -6,19 +6,21 @@ import difflib
 import math
 import os
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.checking import checked, replace
 from impc.errors import DataError, FallError, ImpcError, InputError, blamed
 from impc.files import checks
 from impc.files.apart import match_apart
 from impc.files.causality import departures, misaligned, rows_later
 from impc.files.checks import Notice, fault, finding
-from impc.files.clock import column_of, on_even_instants, read_clock
-from impc.files.configuration import FILL_IN
+from impc.files.clock import Clock, column_of, on_even_instants, read_clock
+from impc.files.configuration import FILL_IN, Configuration, RecordingTable, SignalTable
 from impc.files.digests import content_digest
 from impc.files.formats import read_table
 from impc.files.resampling import (
@@ -31,21 +33,12 @@ from impc.files.resampling import (
     shifted,
     steps_of,
 )
-from impc.files.units import si_unit
+from impc.files.table import Table
+from impc.files.units import Unit, si_unit
 from impc.levels import Level
 from impc.model.foresight import physical_disturbances, physical_states
-from impc.model.plant import UNKNOWN
+from impc.model.plant import UNKNOWN, Plant
 from impc.model.recordings import Label, Recording
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from impc.arrays import Array
-    from impc.files.clock import Clock
-    from impc.files.configuration import Configuration, RecordingTable, SignalTable
-    from impc.files.table import Table
-    from impc.files.units import Unit
-    from impc.model.plant import Plant
 
 T = TypeVar("T")
 # Ratios to half the range above which offset and drift are reported.

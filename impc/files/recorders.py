@@ -10,21 +10,17 @@ import io
 import logging
 import warnings
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.errors import DataError, OutputError
 from impc.extras import optional
 from impc.files.alignment import aligned, own_clocks
-from impc.files.table import make_table
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.files.table import Table
+from impc.files.table import Table, make_table
 
 # Kinds of scaling that nptdms applies.
 _SCALES = (

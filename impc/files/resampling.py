@@ -21,15 +21,13 @@ devices hold a value until the next sample.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from collections.abc import Mapping
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from impc.arrays import Array, IntArray
+from impc.arrays import Array, IntArray
 
 # Stopband attenuation in dB; the largest passband ripple is 10^(-70/20) = 3e-4.
 _ATTENUATION = 70.0

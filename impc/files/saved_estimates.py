@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,16 +27,11 @@ from impc.inverse.minimiser import Ended
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
-from impc.model.plant_family import plant_at
+from impc.model.plant_family import PlantFamily, plant_at
 from impc.model.recordings import Label, Recording
 from impc.model.signal_errors import KINDS
 from impc.model.structure import Structure
 from impc.model.weights import Weights
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from impc.model.plant_family import PlantFamily
 
 _SIGNALS = ("states", "controls", "disturbances", "outputs", "commands")
 # Conversion of plain fields by annotation.

@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from impc.errors import ImpcError, InputError, brief
 from impc.files.apart import matrices_apart
 from impc.files.disk import require_readable
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
 
 #: Endings of the files that hold a plant.
 SAVED = (".mat", ".npz", ".json")

@@ -11,7 +11,9 @@ import html
 import io
 import re
 import zipfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,17 +22,11 @@ from impc.errors import DataError, one_line
 from impc.extras import optional
 from impc.files.cells import WORD, Column, kind_of
 from impc.files.delimited import text_cell
-from impc.files.layout import HEAD, Row, extent, first_block, table_of, written_heading
-from impc.files.table import OTHER_SHEET
+from impc.files.layout import HEAD, Block, Row, extent, first_block, table_of, written_heading
+from impc.files.table import OTHER_SHEET, Table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
-
     import pandas as pd
-
-    from impc.files.layout import Block
-    from impc.files.table import Table
 
 _LONGEST_NAME = 31  # characters of a sheet name
 _ANY_LENGTH = 32_767  # characters of a cell

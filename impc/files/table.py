@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from impc.arrays import Frozen, frozen, with_shape
+from impc.arrays import Array, Frozen, frozen, with_shape
 from impc.checking import checked
 from impc.errors import DataError
 from impc.files.alignment import aligned, own_clocks, rising, unwrapped
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from impc.arrays import Array
 
 #: Why a sheet of a workbook is skipped.
 OTHER_SHEET = "is another sheet"

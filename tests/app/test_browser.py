@@ -13,16 +13,14 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
+from playwright.sync_api import ConsoleMessage, Page
 
 import impc
 from tests.app.serving import ROOT, german, serving, sheet
 from tests.files.samples import workbook
-
-if TYPE_CHECKING:
-    from playwright.sync_api import ConsoleMessage, Page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome") or ""
 pytestmark = pytest.mark.skipif(

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,10 +24,6 @@ from impc.cli.main import main
 from tests.cli.test_plan import EXACT
 from tests.studies.cohort.carts import write_study
 from tests.studies.selection.test_methods import MINE, blood_study
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 
 __all__ = ["GOLDEN", "RUNS", "Numbers"]
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.golden.runs import GOLDEN, RUNS
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KEPT = json.loads(GOLDEN.read_text(encoding="utf-8"))
 

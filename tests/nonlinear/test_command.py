@@ -6,8 +6,9 @@ import html
 import importlib
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,11 +18,7 @@ from click.testing import CliRunner, Result
 import impc
 from impc.cli.main import main
 from impc.files.results import read_result
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from impc.nonlinear.problem import OptimalControlProblem
+from impc.nonlinear.problem import OptimalControlProblem
 
 pytestmark = pytest.mark.full
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from docs.layers import imports, subpackage
 from tests.documents.blocks import ROOT
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 # Neither the interpreter's finders nor those of an editable installation find the folder.
 HIDDEN = """

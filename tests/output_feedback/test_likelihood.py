@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
 import impc
+from impc.arrays import Array
 from impc.output_feedback.compiled_filter import Likelihood
 from impc.output_feedback.likelihood import (
     NoiseDirections,
@@ -19,9 +20,6 @@ from impc.output_feedback.likelihood import (
 from impc.output_feedback.observer import believed_filter
 from impc.output_feedback.simulation import PersonTrial, joint_loop, simulate_person
 from tests.support import extrapolated_slope, named_plant, plant_of
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
 
 pytestmark = pytest.mark.full
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import itertools
 import json
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import impc
 from experiments.search_problems import stick
+from impc.arrays import Array
 from impc.assess.variance_accounted_for import explained_share
 from impc.levels import Level
 from impc.reporting.document import Check, Checks, Copy, Report
@@ -25,11 +27,6 @@ from impc.studies.fit.subject import fit_recordings
 from impc.studies.fit.verdict import RULES, UNDETERMINED, WEIGHTS
 from tests.studies.fit.test_verdict import explained, model_error
 from tests.support import present
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from impc.arrays import Array
 
 
 def made_up(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from functools import cache
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import control
 import numpy as np
@@ -26,14 +26,11 @@ from impc.studies.fit.facts import named_gains
 from impc.studies.fit.figures import movement_figure, shown_window, statements_figure
 from impc.studies.fit.first import FitProgress
 from impc.studies.fit.report import fallen_report, fit_report
-from impc.studies.fit.result import FittedParameter
+from impc.studies.fit.result import FitResult, FittedParameter
 from impc.studies.fit.settings import missing
 from impc.studies.fit.subject import fit_recordings, stages
 from impc.studies.fit.verdict import GAIN, RULES, WEIGHTS
 from tests.support import regulator
-
-if TYPE_CHECKING:
-    from impc.studies.fit.result import FitResult
 
 SEED = 20264
 
