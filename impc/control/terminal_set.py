@@ -140,9 +140,9 @@ class TerminalSet(Value):
 
     def to_pytope(self) -> Any:
         """Return the set as a `pytope.Polytope` in half-space form."""
-        pytope = optional("pytope", "terminal set")
         if not len(self.h):
             raise InputError("terminal set", "is the whole space", "give at least one bound")
+        pytope = optional("pytope", "terminal set")
         # pytope 0.0.4 squeezes a single right side to a scalar: repeat the row.
         twice = slice(None) if len(self.h) > 1 else [0, 0]
         return pytope.Polytope(np.array(self.H[twice]), np.array(self.h[twice]))

@@ -246,7 +246,8 @@ def seen_at(end: Fitted) -> Seen:
 def _hides_states(problem: Problem) -> bool:
     """Whether initial states are searched that no output shows."""
     searched = problem.searched_states
-    return bool(np.linalg.matrix_rank(problem.plant.C[:, :searched]) < searched)
+    C = problem.plant.C[:, :searched]
+    return searched > 0 and bool(np.linalg.matrix_rank(C) < searched)
 
 
 def _starts(problem: Problem, few: bool) -> Iterator[tuple[Problem, LqrSolution]]:
