@@ -8,7 +8,7 @@ statistics may stand below it; more rows of numbers are an error, as they may be
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, count
@@ -312,11 +312,11 @@ def _named(heads: Sequence[str], units: Sequence[str], level: Sequence[str]) -> 
     names = [name or above for name, above in zip(kept, level, strict=True)]
     again, group = _repeated(names), ""
     made: list[str] = []
-    known = set[str]()
+    known, numbers = set[str](), defaultdict[str, Iterator[int]](lambda: count(2))
     for name, above in zip(names, level, strict=True):
         group = above or group
         whole = f"{group} {name}" if name in again and group else name
-        numbered = (f"{whole}_{number}" for number in count(2))
+        numbered = (f"{whole}_{number}" for number in numbers[whole])  # goes on where it ended
         made.append(next(one for one in chain([whole], numbered) if not one or one not in known))
         known.add(made[-1])
     changed = [f"{new!r}" for old, new in zip(names, made, strict=True) if old != new]
