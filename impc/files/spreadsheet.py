@@ -33,9 +33,9 @@ _ANY_LENGTH = 32_767  # characters of a cell
 _WIDEST, _LOOKED_AT = 100, 200  # column width in characters; rows that determine it
 _NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
 _RELATIONS = "xl/_rels/workbook.xml.rels"
-_HIDDEN = re.compile(rb"<(?:\w+:)?(?:row|col)\s[^>]*hidden=[\"'](?:1|true)[\"'][^>]*>")
+_HIDDEN = re.compile(rb"<(?:\w+:)?(row|col)\s[^>]*hidden=[\"'](?:1|true)[\"'][^>]*>")
 _HIDDEN_ODS = re.compile(
-    rb"<table:table-(?:row|column)\s[^>]*table:visibility=[\"'](?:collapse|filter)"
+    rb"<table:table-(row|col)(?:umn)?\s[^>]*table:visibility=[\"'](?:collapse|filter)"
 )
 
 
@@ -172,14 +172,14 @@ def _hidden(path: Path, sheet: _Sheet, rows: range, width: int) -> str:
             targets = [_attribute(tag, "Target") for tag in tags if _attribute(tag, "Id") == wanted]
             files = [f"xl/{name.removeprefix('/xl/')}" for name in targets]
             own = [archive.read(name) for name in files if name in archive.namelist()]
-    tags = [found[0] for part in own for found in (_HIDDEN_ODS if ods else _HIDDEN).finditer(part)]
-    columns = [tag for tag in tags if b"col" in tag[: tag.index(b" ")]]
-    columns = [
-        tag for tag in columns if int(_attribute(tag, "min") or 0) <= sheet.corner[1] + width
-    ]
+    marked = [(found[1], found[0]) for part in own
+              for found in (_HIDDEN_ODS if ods else _HIDDEN).finditer(part)]  # fmt: skip
+    last = sheet.corner[1] + width
+    columns = [tag for kind, tag in marked
+               if kind == b"col" and int(_attribute(tag, "min") or 0) <= last]  # fmt: skip
     # Rows of .ods have no numbers.
-    numbers = [int(_attribute(tag, "r") or 0) - sheet.corner[0] for tag in tags
-               if b"row" in tag[: tag.index(b" ")]]  # fmt: skip
+    numbers = [int(_attribute(tag, "r") or 0) - sheet.corner[0]
+               for kind, tag in marked if kind == b"row"]  # fmt: skip
     inside = [number for number in numbers if ods or number in rows]
     first = f", the first {inside[0] + sheet.corner[0]}" if inside and not ods else ""
     said = [f"{len(inside)} hidden rows{first}"] if inside else []

@@ -99,10 +99,11 @@ def rows(cells: Sequence[Sequence[Any]], hidden: Sequence[int] = ()) -> Callable
     return lambda path: workbook(path, hidden, Data=cells)
 
 
-def filtered(path: Path) -> None:
+def filtered(path: Path, blank: str = " ") -> None:
     """A workbook of LibreOffice, of which a filter hides a row."""
     ods_file(path, {"Info": [["by", "hand"]], "Data": sheet_of(TIME.tolist())})
-    row, hides = b"<table:table-row", b'<table:table-row table:visibility="filter"'
+    row = b"<table:table-row"
+    hides = row + blank.encode() + b'table:visibility="filter"'
     repacked(path, content=lambda text: hides.join(text.rsplit(row, 1)))
 
 
@@ -390,6 +391,10 @@ SAID: dict[str, tuple[tuple[str, Content], str]] = {
     ),
     "hidden columns": ((".xlsx", narrowed), "sheet 'Data' has 1 hidden columns, which are read"),
     "filtered": ((".ods", filtered), "sheet 'Data' has 1 hidden rows, which are read like"),
+    "a tag of two lines": (
+        (".ods", lambda path: filtered(path, "\n")),
+        "sheet 'Data' has 1 hidden rows, which are read like",
+    ),
     "two blocks": ((".csv", "\n".join(VICON)), f"line 307 ('Trajectories') {ENDS}"),
     "a trial below": (
         (".csv", "\n".join([*BLOCK, "", *BLOCK])), f"line 303 ('time,tilt,tap') {ENDS}"
