@@ -117,15 +117,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     sys.modules.pop("own_point", None)
 
 
-def fitted(folder: Path, config: str, out: str) -> Result:
+def fitted(folder: Path, config: str, out: str, *options: str) -> Result:
     (folder / f"{out}.toml").write_text(config, encoding="utf-8")
-    return run("fit", "trial_1.csv", "trial_2.csv", "--config", f"{out}.toml", "--out", out)
+    trials = "trial_1.csv", "trial_2.csv"
+    return run("fit", *trials, "--config", f"{out}.toml", "--out", out, *options)
 
 
 @pytest.fixture(scope="module")
 def done(folder: Path) -> Result:
-    done = fitted(folder, CONFIG, "out")
+    opened: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("click.launch", opened.append)
+        done = fitted(folder, CONFIG, "out", "--open")
     assert done.exit_code == 0, done.stderr
+    assert opened == [str(Path("out", "report.html"))]
     return done
 
 
