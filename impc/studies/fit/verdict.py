@@ -354,7 +354,7 @@ _KINDS: tuple[Kind[FitResult], ...] = (
         "The interval of the gain is too narrow",
         "{conflict}",
         "The model is not contradicted, but the recordings leave a wider range of gains than the "
-        "interval. This happens in short trials in which the limit is reached.",
+        "interval.",
         (
             "Record longer trials, or more of them, and fit all together.",
             "Compare groups by measures of movement, or by all people together (impc cohort).",
