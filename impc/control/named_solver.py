@@ -27,6 +27,7 @@ import scipy.optimize
 from impc.arrays import Array, BoolArray, IntArray
 from impc.control.compiled_dual import DEPENDENT
 from impc.control.compiled_values import Rows
+from impc.control.halfspaces import PIVOTS
 from impc.errors import InputError
 from impc.settings_files import IPOPT_ALONE
 
@@ -220,6 +221,7 @@ def excluded_row(rows: Rows, slack: Array) -> int:
         b_ub=slack[hard] / b,
         bounds=[*[(None, None)] * width, (-1.0, None)],
         method="highs",
+        options={"maxiter": PIVOTS * (width + len(b))},
     )
     if answer.status != 0 or not answer.x[-1] > _EXCEEDED:
         return -1
