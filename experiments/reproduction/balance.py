@@ -21,7 +21,7 @@ _JUDGED = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9]
 
 def balance_values(evidence: Evidence) -> dict[str, Any]:
     """Values of (2.1), tables 2.1 to 2.6, figures 2.1 to 2.6 and the claims of chapter 2."""
-    result, sequence = evidence.reliability, np.array(ternary_sequence(5))
+    result, sequence = evidence.reliability, np.array(ternary_sequence())
     energy, half = _sine_energy(), len(sequence) // 2
     rms, band = (_range(table(result, f"icc-{name}")["icc"]) for name in ("rms", "energy"))
     curves = table(result, "cmc")

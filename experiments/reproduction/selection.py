@@ -130,7 +130,7 @@ def key_values(evidence: Evidence) -> dict[str, Any]:
 
     return {
         "yaw": yaw,
-        "yaw_candidates": len(yaw["candidates"]),
+        "yaw_candidates": len(candidates),
         "worst_variance": worst,
         "variance_is_bounded": worst <= 0.35,
         "least_candidate": candidates["least_icc"].min(),
