@@ -89,7 +89,7 @@ test: $(PROJECT) $(LOCKED) $(POLYTOPE)
 	$(PYTEST) -m "not full and not slow"
 
 full: env $(FILTER)
-	$(PYTEST) -m full
+	$(PYTEST) -m "full and not slow"
 
 check: $(PROJECT) $(LOCKED)
 	$(PY) -m ruff check .
