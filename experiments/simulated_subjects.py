@@ -28,14 +28,14 @@ from impc.model.recordings import Recording
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
 
-__all__ = ["Subject", "noisy_recordings", "simulated_subject"]
+__all__ = ["Subject", "noisy_recordings", "simulated_subject", "standard_errors_from"]
 
 
 class Subject(NamedTuple):
     """One fit compared with the truth."""
 
     below_ceiling: float  # VAF of the truth minus that of the fit, points, scaled outputs
-    # Distance of each shown entry of K from the centre of its interval, which spans 3.92; the same
+    # Distance of each shown entry of K to the centre of its interval in standard errors; the same
     # along the directions of `GainCovariance` (n,).
     entries: Array
     directions: Array
@@ -74,9 +74,20 @@ def simulated_subject(seed: int, limit: float, ceiling: float = 0.9) -> Subject:
     ends = np.array([[intervals[index].low, intervals[index].high] for index in shown])
     return Subject(
         100 * (fitted.misfit**2 - noise) / samples,
-        (ends.mean(axis=1) - np.ravel(truth)[shown]) / (np.ptp(ends, axis=1) / (2 * TWO_SIDED)),
+        standard_errors_from(np.ravel(truth)[shown], ends),
         covariance.along(estimate.K - truth) / covariance.deviations,
     )
+
+
+def standard_errors_from(truth: Array, ends: Array) -> Array:
+    """Distances of `truth` (k,) to the centres of 95 % intervals `ends` (k, 2) in standard errors.
+
+    0 for an interval without ends, which contains every value.
+    """
+    finite = np.all(np.isfinite(ends), axis=1)
+    distances, (low, high) = np.zeros(len(ends)), ends[finite].T
+    distances[finite] = TWO_SIDED * (low + high - 2 * truth[finite]) / (high - low)
+    return distances
 
 
 def _shown(plant: Plant) -> IntArray:

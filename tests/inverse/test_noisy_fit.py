@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.signal
+import scipy.stats
 
 import impc
 from experiments.benchmarks.workloads import Workload, seat
 from experiments.coverage import cart, noisy_trial, true_controller
-from experiments.simulated_subjects import simulated_subject
+from experiments.simulated_subjects import simulated_subject, standard_errors_from
 from impc.assess.assessments import evaluate_method
 from impc.assess.covariance import gain_covariance
 from impc.assess.printed_gain import gain_estimate
@@ -96,6 +97,14 @@ def test_noisy_subjects_reach_the_ceiling(limit: float, count: int, each: bool) 
     assert max(item.below_ceiling for item in subjects) < 0.5
     inside = np.array([np.abs(item.entries) <= 3 for item in subjects])
     assert np.all(np.mean(inside, axis=0 if each else None) >= 0.97)
+
+
+def test_an_interval_without_ends_contains_every_gain() -> None:
+    """Of the other, the standard error is 1: the true gain is 1.5 below the centre."""
+    half = scipy.stats.norm.ppf(0.975)
+    ends = np.array([[2 - half, 2 + half], [-np.inf, np.inf]])
+    distances = standard_errors_from(np.array([0.5, 1.0]), ends)
+    np.testing.assert_allclose(distances, [1.5, 0.0], rtol=1e-7)
 
 
 def test_weights_are_found_where_the_free_gain_is_unstable() -> None:
