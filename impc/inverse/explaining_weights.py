@@ -9,6 +9,7 @@ gain (`metric_family`).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,10 @@ from impc.inverse.unknowns import Fitted
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 
+# Largest relative misfit at which weights of an exact gain are accepted. If few samples identify S,
+# a rounding error of K is compensated by an S that no weights have.
+_NEARLY = 1e-6
+
 
 @dataclass(frozen=True)
 class WeightsBehind:
@@ -36,7 +41,13 @@ class WeightsBehind:
     explained: bool  # Whether that is at most 1e-9 of the recorded outputs
     reason: str  # Why there are none, or why they do not explain; otherwise empty
 
+    @property
+    def accepted(self) -> bool:
+        """Whether the recordings are of these weights, but for rounding of the gain."""
+        return self.misfit <= _NEARLY * recorded_size(self.gain.problem)
 
+
+@functools.lru_cache(maxsize=16)
 def weights_behind(fit: Fitted) -> WeightsBehind:
     """Find the weights of least condition number with the gain and check that they explain."""
     problem = fit.problem

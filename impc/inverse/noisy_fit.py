@@ -65,9 +65,6 @@ from impc.model.weights import Weights, condition_number, normalised
 _ROUGH = 0.1
 # Continue the search if the free gain fits better at this significance level (likelihood ratio).
 _RARE = 0.01
-# Largest relative misfit at which weights of an exact gain are accepted. If few samples identify S,
-# a rounding error of K is compensated by an S that no weights have.
-_NEARLY = 1e-6
 # Relative difference below which two misfits count as equal.
 _SAME = 1e-3
 # Largest number of regulators used as starts.
@@ -145,8 +142,7 @@ def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Est
     free = ends[0]
     if free.explained:  # otherwise no weights have exactly this gain: use the direct form
         behind = weights_behind(free)
-        nearly = behind.misfit <= _NEARLY * recorded_size(problem)
-        if nearly and behind.equivalent is not None:
+        if behind.accepted and behind.equivalent is not None:
             weights = behind.equivalent.weights
             return _finish(free, free.problem, weights, evaluations=0, converged=True)
     found, spent = _weights(free, start)

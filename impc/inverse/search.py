@@ -24,6 +24,7 @@ import numpy as np
 from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import ImpcError, SolverError
+from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.laws import FixedLaw, GainLaw
 from impc.inverse.minimiser import PROMISE, Stop
 from impc.inverse.prediction import correction
@@ -58,9 +59,9 @@ _LONGEST = 0.98
 _RATIOS = (10.0, 1.0)
 # 1 / SD of the prior in whitened coordinates for a search without a start.
 _WEAK = 1e-3
-# Largest numbers of evaluations of predictions, of initial states and of simulations; decrease per
-# recorded value at which a prediction ends.
-_PREDICTED, _STATES, _SIMULATED, _ROUGH = 25, 20, 200, 1e-3
+# Largest numbers of evaluations of predictions, of initial states and of simulations, of which one
+# of a short recording takes a millisecond; decrease per recorded value at which a prediction ends.
+_PREDICTED, _STATES, _SIMULATED, _SHORT, _ROUGH = 25, 20, 200, 2000, 1e-3
 # Promise at which a search of long recordings ends, since it is a start of a refit, and that of
 # short ones per recorded value.
 _START, _FINE = 0.5, 1e-8
@@ -107,7 +108,7 @@ def gain_ends(problem: Problem) -> list[Fitted]:
             continue
         spent += ends[-1].evaluations
         best, agreed = best_of(ends)
-        if best.explained or agreed >= wanted:
+        if agreed >= wanted or (best.explained and weights_behind(best).accepted):
             break
     if not ends:
         raise SolverError(
@@ -202,10 +203,14 @@ def stop_at(problem: Problem, promise: float, evaluations: int) -> Stop:
 
 
 def best_of(ends: list[Fitted]) -> tuple[Fitted, int]:
-    """End of least objective, and the number of ends at the same minimum."""
+    """End of least objective, and the number of ends at the same minimum.
+
+    Of ends that explain the recordings, one whose gain weights have.
+    """
     best = min(ends, key=lambda end: end.objective)
     if best.explained:
-        return best, sum(end.explained for end in ends)
+        exact = [end for end in ends if end.explained]
+        return next((end for end in exact if weights_behind(end).accepted), best), len(exact)
     longer = seen_at(best).colour if best.stabilises else 1.0
     near = [end for end in ends if end.objective - best.objective <= _NEAR * longer]
     if len(near) < 2 or not best.stabilises:
@@ -299,12 +304,13 @@ def _simulated(problem: Problem, begin: LqrSolution, predicted: Fitted) -> Fitte
     K, S = np.array(begin.K), np.array(predicted.S)
     there = problem.at(np.array(predicted.problem.starts), np.array(problem.logarithms))
     share, reason = 1.0, ""
+    most = _SHORT if problem.recorded_numbers <= FEW else _SIMULATED
     for _ in range(_PREDICTED):
         gain = K + share * (predicted.K - K)
         if stabilises(problem.plant, gain):
             _, reason = misfit_or_reason(there, gain, S)
             if not reason:
-                return refine_gain(there, gain, S, prior=_WEAK)
+                return refine_gain(there, gain, S, prior=_WEAK, max_evaluations=most)
         share *= _BACK
     raise SolverError(
         "gain", reason or "no gain stabilises the plant", "check the plant and the bounds"

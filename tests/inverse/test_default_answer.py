@@ -37,7 +37,7 @@ KINDS: dict[str, tuple[Callable[[int], Known | None], int, int, int, int]] = {
     "three inputs": (lambda seed: random_problem(seed, 3), 3, 100, 1, 1),
     # From an unknown state.
     "half": (lambda seed: random_problem(seed, half=True), 3, 67, 6, 0),
-    "half, two inputs": (lambda seed: random_problem(seed, 2, half=True), 1, 50, 5, 5),
+    "half, two inputs": (lambda seed: random_problem(seed, 2, half=True), 1, 50, 5, 0),
 }
 
 
