@@ -126,7 +126,7 @@ wheel: env
 	done
 
 slow: env $(FILTER)
-	$(PY) -m pytest -m slow
+	$(PYTEST) --dist load --maxschedchunk 1 -m slow
 
 coverage: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.printed_intervals --recordings 300

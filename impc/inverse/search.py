@@ -80,7 +80,7 @@ def fit_gain(problem: Problem) -> Fitted:
 
 
 def gain_ends(problem: Problem) -> list[Fitted]:
-    """Ends of searches for the gain, the lowest first.
+    """Ends of searches for the gain, the best first (`best_of`).
 
     The end of long recordings is that of one search, a start for others (`ends`).
     """
