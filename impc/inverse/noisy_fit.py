@@ -67,8 +67,8 @@ _ROUGH = 0.1
 _RARE = 0.01
 # Relative difference below which two misfits count as equal.
 _SAME = 1e-3
-# Largest number of regulators used as starts.
-_BEGINNINGS = 3
+# Largest numbers of regulators used as starts, and of gain searches from weights that fit better.
+_BEGINNINGS, _AGAIN = 3, 3
 
 
 def first_end(problem: Problem) -> Fitted | None:
@@ -140,11 +140,9 @@ def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Est
     else:
         ends = gain_ends(problem) if start is None else [free_gain(problem, start)]
     free = ends[0]
-    if free.explained:  # otherwise no weights have exactly this gain: use the direct form
-        behind = weights_behind(free)
-        if behind.accepted and behind.equivalent is not None:
-            weights = behind.equivalent.weights
-            return _finish(free, free.problem, weights, evaluations=0, converged=True)
+    exact = _exact(free, 0)
+    if exact is not None:
+        return exact
     found, spent = _weights(free, start)
     refitted = None
     if problem.recorded_numbers > FEW and not free.explained:
@@ -154,11 +152,17 @@ def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Est
         refitted = SearchEnd.of(free)
         found, again = _weights(free, found.weights)
         spent += again + sum(end.evaluations for end in ends)
-    elif found.misfit < free.misfit:  # the free gain is in a local minimum
-        free = free_gain(free.problem, found.weights)
-        ends = [free, *ends]
-        found, more = _weights(free, found.weights)
-        spent += more
+    else:
+        for _ in range(_AGAIN):
+            if found.misfit >= free.misfit:
+                break
+            free = free_gain(free.problem, found.weights)  # the one before is in a local minimum
+            exact = _exact(free, spent)
+            if exact is not None:
+                return exact
+            ends = [free, *ends]
+            found, more = _weights(free, found.weights)
+            spent += more
     settled = free.problem
     if problem.own_unknowns:
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
@@ -166,6 +170,15 @@ def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Est
     if not one.explained:
         one = replace(one, refitted=refitted, rivals=tuple(map(SearchEnd.of, ends[1:])))
     return one if start is None else _not_worse(problem, free, one, start)
+
+
+def _exact(free: Fitted, evaluations: int) -> Estimate | None:
+    """Estimate of the weights with exactly this gain, if they explain the recordings."""
+    behind = weights_behind(free) if free.explained else None
+    if behind is None or behind.equivalent is None or not behind.accepted:
+        return None
+    weights = behind.equivalent.weights
+    return _finish(free, free.problem, weights, evaluations=evaluations, converged=True)
 
 
 def _not_worse(problem: Problem, free: Fitted, one: Estimate, start: Weights) -> Estimate:

@@ -7,7 +7,8 @@ In the coordinates d of dX = L D L', D = sum d_i basis_i, with an epigraph varia
                 D + I - L^-1 L^-T >= 0                  (X + dX >= I, in coordinates of L)
                 a I - (X + L D L') / kappa >= 0         (X + dX <= kappa a I).
 
-Each matrix inequality is scaled so that its entries are of order one for every kappa.
+Each matrix inequality is scaled so that its entries are of order one for every kappa, and the norm
+so that those of residual and jacobian are.
 """
 
 from __future__ import annotations
@@ -57,12 +58,15 @@ def block_basis(n: int, m: int) -> Array:
 def solve_step(program: StepProgram, radius: float) -> tuple[Array, float]:
     """Step d (k,) of norm at most `radius`, and the objective predicted by the model."""
     count, kappa = len(program.basis), float(scipy.linalg.eigvalsh(program.X)[-1])
+    sizes = [*np.ravel(program.jacobian), *program.residual, program.rest]
+    unit = float(np.linalg.norm(sizes)) or 1.0  # of f
     cost_weight, effort = program.condition_weight * kappa, program.fit_weight
+    effort *= unit**2 if program.squared else unit
     scale = max(cost_weight, effort)
     linear, squares = np.zeros(count + 2), np.zeros(count + 2)
     linear[count] = cost_weight / scale
     (squares if program.squared else linear)[-1] = effort / scale
-    cones = [*_inequalities(program, kappa), _ball(count, radius), _epigraph(program)]
+    cones = [*_inequalities(program, kappa), _ball(count, radius), _epigraph(program, unit)]
     step = solve_semidefinite(linear, cones, squares=squares).y[:count]
     return step, _predict(program, step)
 
@@ -101,9 +105,9 @@ def _ball(count: int, radius: float) -> Cone:
     return norm_bound(np.eye(count + 2, count), np.zeros(count + 2), constant=radius)
 
 
-def _epigraph(program: StepProgram) -> Cone:
+def _epigraph(program: StepProgram, unit: float) -> Cone:
     count, size = len(program.basis), len(program.residual)
     vectors, bound = np.zeros((count + 2, size + 1)), np.zeros(count + 2)
-    vectors[:count, :size] = program.jacobian.T
+    vectors[:count, :size] = program.jacobian.T / unit
     bound[-1] = 1.0
-    return norm_bound(vectors, bound, offset=np.append(program.residual, program.rest))
+    return norm_bound(vectors, bound, offset=np.append(program.residual, program.rest) / unit)

@@ -14,7 +14,7 @@ from impc.inverse import table31
 from impc.inverse.equivalent_weights import SLACK
 from impc.inverse.laws import GainLaw
 from impc.inverse.problem import controller_for
-from impc.inverse.proximal_step import block_basis
+from impc.inverse.proximal_step import StepProgram, block_basis, solve_step
 from impc.inverse.residuals import keeps_hard, residual_only
 from impc.inverse.unknowns import linear_at
 from impc.model.weights import condition_number
@@ -208,3 +208,24 @@ def test_iterates_that_do_not_stabilise_or_diverge_are_named_and_finite() -> Non
         assert said in found.reason
         assert np.all(np.isfinite(found.residual))
         assert np.linalg.norm(found.residual) > 1e3
+
+
+@pytest.mark.parametrize("squared", [False, True])
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_step_does_not_depend_on_the_unit_of_the_residual(unit: float, squared: bool) -> None:
+    """Regression: nearly exact recordings have residuals of 1e4 SD, and steps were 1e-8."""
+    step = np.array([0.1, -0.05, 0.2, 0.1])  # of least residual; increases all eigenvalues
+    X, jacobian = np.diag([3.0, 1.0, 2.0]), unit * np.random.default_rng(1).normal(size=(4, 4))
+    program = StepProgram(
+        X=X,
+        L=np.sqrt(X),
+        n=2,
+        basis=block_basis(2, 1),
+        jacobian=jacobian,
+        residual=-jacobian @ step,
+        rest=unit,
+        fit_weight=1.0,
+        condition_weight=1e-14 * unit ** (1 + squared),
+        squared=squared,
+    )
+    np.testing.assert_allclose(solve_step(program, 0.5)[0], step, atol=1e-4)
