@@ -2,11 +2,12 @@
 
     gain with initial states and parameters  ->  weights with that gain, or the direct form (3.6)
 
-A gain that explains the recordings to 1e-9 is converted to weights by one semidefinite program.
-With noise, a fitted gain usually has no weights: then the direct form in whitened coordinates
-(`natural_search`) fits the weights. It starts from balanced weights and, if these leave more than
-noise, from those with the nearest gain in |J (K(Q, R) - K)|^2, J the derivative of the residual.
-Finally the initial states are refitted with the controller fixed.
+A gain that explains the recordings to 1e-9 is converted to weights by one semidefinite program, or
+by the reduced form if none have it. With noise, a fitted gain usually has no weights: then the
+direct form in whitened coordinates (`natural_search`) fits the weights. It starts from balanced
+weights and, if these leave more than noise, from those with the nearest gain in
+|J (K(Q, R) - K)|^2, J the derivative of the residual. Finally the initial states are refitted with
+the controller fixed.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ from impc.inverse.search import (
 )
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.starts import regulators
+from impc.inverse.table31 import reduced_from
 from impc.inverse.unknowns import Fitted, Unknowns
 from impc.model.plant import change_coordinates
 from impc.model.riccati import LqrSolution, solve_lqr
@@ -173,12 +175,18 @@ def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Est
 
 
 def _exact(free: Fitted, evaluations: int) -> Estimate | None:
-    """Estimate of the weights with exactly this gain, if they explain the recordings."""
-    behind = weights_behind(free) if free.explained else None
-    if behind is None or behind.equivalent is None or not behind.accepted:
+    """Estimate of weights that explain the recordings as the gain does, with this gain or not."""
+    if not free.explained:
         return None
-    weights = behind.equivalent.weights
-    return _finish(free, free.problem, weights, evaluations=evaluations, converged=True)
+    behind, problem = weights_behind(free), free.problem
+    if behind.equivalent is not None and behind.accepted:
+        weights = behind.equivalent.weights
+    else:
+        other = reduced_from(behind)
+        if not other.explained:
+            return None
+        problem, weights, evaluations = other.problem, other.stage_weights, other.evaluations
+    return _finish(free, problem, weights, evaluations=evaluations, converged=True)
 
 
 def _not_worse(problem: Problem, free: Fitted, one: Estimate, start: Weights) -> Estimate:

@@ -193,10 +193,12 @@ def inverse_mpc(
         direct = _simulated("inverse_mpc", posed, K, S, weights=found.weights, **more)
         if direct.explained or not explain:
             return direct
-        gain = refine_gain(posed, K, S)
-        behind = weights_behind(gain if gain.converged else fit_gain(posed))
-        spent = found.evaluations + behind.gain.evaluations
-        return _explaining("inverse_mpc", behind, spent) if behind.explained else direct
+        behind = weights_behind(refine_gain(posed, K, S))
+        exact = _explaining(behind) if behind.explained else _reduced(posed)
+        if not exact.explained:
+            return direct
+        spent = found.evaluations + exact.evaluations
+        return replace(exact, method=direct.method, evaluations=spent)
 
     return with_or_without_set(problem, fit, lambda found: found.explained)
 
@@ -206,50 +208,53 @@ def inverse_mpc_reduced(problem: Problem) -> Estimate:
     """Reduced inverse MPC: fit the gain of the constrained controller, then solve for weights.
 
     If the gain does not explain the recordings or has no weights, the direct form runs, and a gain
-    search continues from its solution. The estimate then has this gain, the nearest weights and the
-    reason why they do not explain the recordings.
+    search continues from its solution. The estimate then has this gain, the nearest weights if they
+    can be simulated, and the reason why they do not explain the recordings.
     """
     return with_or_without_set(problem, _reduced, lambda found: found.explained)
 
 
 def _reduced(problem: Problem) -> Estimate:
-    first = weights_behind(fit_gain(problem))
+    return reduced_from(weights_behind(fit_gain(problem)))
+
+
+def reduced_from(first: WeightsBehind) -> Estimate:
+    """Reduced form from the weights behind a fitted gain."""
     if first.explained:
-        return _explaining("inverse_mpc_reduced", first, first.gain.evaluations)
+        return _explaining(first)
+    problem = first.gain.problem
     try:
         direct = inverse_mpc(
             problem, _most_promising(problem), max_iterations=_DETOUR, explain=False
         )
     except SolverError:  # the loop diverges with every starting regulator
-        if first.equivalent is None:
-            raise
-        return _missing(first, first.equivalent.weights)
+        return _missing(first, None if first.equivalent is None else first.equivalent.weights)
     second = weights_behind(refine_gain(problem, direct.gain, direct.metric))
     best = min(first, second, key=lambda item: item.misfit)
     if best.explained:
-        return _explaining("inverse_mpc_reduced", best, best.gain.evaluations)
+        return _explaining(best)
     if best.misfit <= direct.misfit and best.equivalent is not None:
         return _missing(best, best.equivalent.weights)
     return _missing(first, direct.stage_weights)
 
 
-def _explaining(name: str, behind: WeightsBehind, evaluations: int) -> Estimate:
+def _explaining(behind: WeightsBehind) -> Estimate:
     """Estimate with the weights of least condition number that explain the recordings."""
     assert behind.equivalent is not None  # explained
     problem, weights = behind.gain.problem, behind.equivalent.weights
     solution = solve_lqr(problem.plant, weights)
     return _simulated(
-        name,
+        "inverse_mpc_reduced",
         problem,
         np.array(solution.K),
         np.array(solution.S),
         weights=weights,
         metrics=behind.metrics,
-        evaluations=evaluations,
+        evaluations=behind.gain.evaluations,
     )
 
 
-def _missing(behind: WeightsBehind, weights: Weights) -> Estimate:
+def _missing(behind: WeightsBehind, weights: Weights | None) -> Estimate:
     """Estimate of a gain whose weights do not explain the recordings."""
     gain = behind.gain
     return _simulated(

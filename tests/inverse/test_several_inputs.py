@@ -77,11 +77,14 @@ def fault(path: str, m: int, seed: int) -> str:
         ("reduced", 2, range(10), 0),
         # More inputs than states: the search of the metric passed a singular one and raised.
         ("reduced", 3, [25], 0),
+        # No weights have the exact gain that all searches end at; the direct form finds another.
+        ("fit", 3, [247], 0),
         pytest.param("fit", 3, range(5), 0, marks=FULL),
         pytest.param("reduced", 3, range(5), 0, marks=FULL),
         # Seeds 2 and 8 converged to misfits of 8e-5 and 3e-5.
         pytest.param("direct", 2, [2, 8], 0, marks=SLOW),
-        pytest.param("direct", 3, [1], 0, marks=FULL),
+        # In the second the gain search after the direct form ends in a local minimum.
+        pytest.param("direct", 3, [1, 141], 0, marks=FULL),
         # The last two started at an eigenvalue of -1e-9 and raised a WeightsError.
         pytest.param("direct", 2, [96], 0, marks=FULL),
         ("direct", 3, [70], 0),
