@@ -51,7 +51,7 @@ help:
 	@echo 'make test       set up .venv, then check and pytest: about ten minutes'
 	@echo 'make full       tests of the site, of all pages, experiments and studies in full size: half an hour'
 	@echo 'make check      ruff check, ruff format --check, mypy --strict'
-	@echo 'make slow       hundreds of recordings, fits and subjects: an hour'
+	@echo 'make slow       hundreds of recordings, fits and subjects: up to two hours'
 	@echo 'make docs       build the site in docs/_build/html; warnings are errors, examples run (minutes)'
 	@echo 'make reproduce  write docs/reproduction: every claim of the dissertation (half an hour)'
 	@echo '                DATA=folder: pages in experiments/ from public recordings (half an hour)'
