@@ -16,7 +16,7 @@ import numpy as np
 
 from impc.arrays import Array
 from impc.errors import SolverError, WeightsError
-from impc.inverse.equivalent_weights import EquivalentWeights, least_condition_weights
+from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.metric_family import fitted_metric, metric_family, unidentified_metrics
 from impc.inverse.problem import EXPLAINED, Problem, recorded_size
 from impc.inverse.residuals import residual_only
@@ -36,7 +36,7 @@ class WeightsBehind:
 
     gain: Fitted  # Fitted gain
     metrics: Array  # Metric, then directions in which it is not identified (k, m, m)
-    equivalent: EquivalentWeights | None  # None if there are none
+    weights: Weights | None  # With the gain, of least condition number; None if there are none
     misfit: float  # 2-norm of the residual of these weights; infinite without
     explained: bool  # Whether that is at most 1e-9 of the recorded outputs
     reason: str  # Why there are none, or why they do not explain; otherwise empty
@@ -54,13 +54,13 @@ def weights_behind(fit: Fitted) -> WeightsBehind:
     metrics = np.array(fit.S)[None]
     try:
         metrics = _metrics(fit)
-        equivalent = least_condition_weights(gain_fibre(problem.plant, fit.K, metrics))
+        weights = least_condition_weights(gain_fibre(problem.plant, fit.K, metrics)).weights
     except (WeightsError, SolverError) as error:
         return WeightsBehind(fit, metrics, None, np.inf, explained=False, reason=str(error))
-    misfit, size = weights_misfit(problem, equivalent.weights), recorded_size(problem)
+    misfit, size = weights_misfit(problem, weights), recorded_size(problem)
     explained = misfit <= EXPLAINED * size
     reason = "" if explained else f"the weights have a relative misfit of {misfit / size:.2g}"
-    return WeightsBehind(fit, metrics, equivalent, misfit, explained, reason)
+    return WeightsBehind(fit, metrics, weights, misfit, explained, reason)
 
 
 def _metrics(fit: Fitted) -> Array:

@@ -195,8 +195,7 @@ def output_penalty(problem: Problem, start: Estimate, begin: Weights | None = No
 def _reduced(problem: Problem, start: Estimate) -> Estimate:
     """Fit the gain under the bounds, then compute weights with that gain."""
     behind = weights_behind(free_gain(start.problem.with_nuisance_fixed(), start.stage_weights))
-    weights = None if behind.equivalent is None else behind.equivalent.weights
-    gain = behind.gain
+    gain, weights = behind.gain, behind.weights
     # The misfit of the gain itself is noise and does not count against the weights.
     missed = weights is None or behind.misfit > (1 + _AS_GOOD) * gain.misfit
     return of_gain(

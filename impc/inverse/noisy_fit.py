@@ -179,9 +179,8 @@ def _exact(free: Fitted, evaluations: int) -> Estimate | None:
     if not free.explained:
         return None
     behind, problem = weights_behind(free), free.problem
-    if behind.equivalent is not None and behind.accepted:
-        weights = behind.equivalent.weights
-    else:
+    weights = behind.weights
+    if weights is None or not behind.accepted:
         other = reduced_from(behind)
         if not other.explained:
             return None

@@ -194,7 +194,7 @@ def inverse_mpc(
         if direct.explained or not explain:
             return direct
         behind = weights_behind(refine_gain(posed, K, S))
-        exact = _explaining(behind) if behind.explained else _reduced(posed)
+        exact = reduced_from(behind) if behind.explained else _reduced(posed)
         if not exact.explained:
             return direct
         spent = found.evaluations + exact.evaluations
@@ -221,47 +221,33 @@ def _reduced(problem: Problem) -> Estimate:
 def reduced_from(first: WeightsBehind) -> Estimate:
     """Reduced form from the weights behind a fitted gain."""
     if first.explained:
-        return _explaining(first)
+        return _with_gain(first, first.weights)
     problem = first.gain.problem
     try:
         direct = inverse_mpc(
             problem, _most_promising(problem), max_iterations=_DETOUR, explain=False
         )
     except SolverError:  # the loop diverges with every starting regulator
-        return _missing(first, None if first.equivalent is None else first.equivalent.weights)
+        return _with_gain(first, first.weights)
     second = weights_behind(refine_gain(problem, direct.gain, direct.metric))
     best = min(first, second, key=lambda item: item.misfit)
-    if best.explained:
-        return _explaining(best)
-    if best.misfit <= direct.misfit and best.equivalent is not None:
-        return _missing(best, best.equivalent.weights)
-    return _missing(first, direct.stage_weights)
+    if best.explained or best.misfit <= direct.misfit:
+        return _with_gain(best, best.weights)
+    return _with_gain(first, direct.stage_weights)
 
 
-def _explaining(behind: WeightsBehind) -> Estimate:
-    """Estimate with the weights of least condition number that explain the recordings."""
-    assert behind.equivalent is not None  # explained
-    problem, weights = behind.gain.problem, behind.equivalent.weights
-    solution = solve_lqr(problem.plant, weights)
-    return _simulated(
-        "inverse_mpc_reduced",
-        problem,
-        np.array(solution.K),
-        np.array(solution.S),
-        weights=weights,
-        metrics=behind.metrics,
-        evaluations=behind.gain.evaluations,
-    )
-
-
-def _missing(behind: WeightsBehind, weights: Weights | None) -> Estimate:
-    """Estimate of a gain whose weights do not explain the recordings."""
+def _with_gain(behind: WeightsBehind, weights: Weights | None) -> Estimate:
+    """Estimate of a fitted gain, or that of the weights if these explain the recordings."""
     gain = behind.gain
+    K, S = gain.K, gain.S
+    if behind.explained and weights is not None:
+        solution = solve_lqr(gain.problem.plant, weights)
+        K, S = solution.K, solution.S
     return _simulated(
         "inverse_mpc_reduced",
         gain.problem,
-        np.array(gain.K),
-        np.array(gain.S),
+        np.array(K),
+        np.array(S),
         weights=weights,
         metrics=behind.metrics,
         evaluations=gain.evaluations,
