@@ -17,6 +17,8 @@ import numpy as np
 from impc.files.table import Table
 
 ROOT = Path(__file__).parents[2]
+# Seconds after which an answer counts as none; a first one on a busy machine compiles for minutes.
+PATIENCE = 600
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Client:
 
 def ask(host: str, method: str, path: str, body: bytes = b"", /, **headers: str) -> Answer:
     """One request; _ is - in names of headers."""
-    connection = http.client.HTTPConnection(host, timeout=120)
+    connection = http.client.HTTPConnection(host, timeout=PATIENCE)
     with contextlib.closing(connection):
         given = {name.replace("_", "-"): value for name, value in headers.items()}
         connection.request(method, path, body, given)

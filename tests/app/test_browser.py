@@ -19,7 +19,7 @@ import pytest
 from playwright.sync_api import ConsoleMessage, Page
 
 import impc
-from tests.app.serving import ROOT, german, serving, sheet
+from tests.app.serving import PATIENCE, ROOT, german, serving, sheet
 from tests.files.samples import workbook
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome") or ""
@@ -52,6 +52,7 @@ def page(study: Path) -> Iterator[Page]:
         name, value = client.cookie.split("=", 1)
         place = {"domain": "127.0.0.1", "path": f"{client.base}/", "httpOnly": True}
         context.add_cookies([{"name": name, "value": value, "sameSite": "Strict", **place}])  # type: ignore[typeddict-item]
+        context.set_default_timeout(1000 * PATIENCE)
         found = context.new_page()
         # Refusals are meant: of a file that is no recording, and of what a hostile report tries.
         meant = re.compile("Content Security Policy|415|sandboxed")
@@ -163,22 +164,22 @@ def test_every_screen_from_dropped_files_to_the_report(
         typed(page, place, value)
     followed(page, "Next: fit")
     accessible(page)
-    page.locator("button:enabled:has-text('Fit')").wait_for(timeout=120_000)  # it is checked first
+    page.locator("button:enabled:has-text('Fit')").wait_for()  # it is checked first
 
 
 @pytest.mark.full
 def test_practice_is_fitted_stopped_gone_on_read_and_compared(page: Page, study: Path) -> None:
     page.goto("/".join(page.url.split("/")[:4]) + "/")  # the start, whatever was open before
-    with page.expect_navigation(timeout=120_000):
+    with page.expect_navigation():
         page.get_by_role("button", name="Practise").click()
     page.get_by_role("link", name="Fit", exact=True).click()
     page.get_by_role("button", name="Fit", exact=True).click()
-    page.locator(".stages li").nth(1).wait_for(timeout=300_000)
+    page.locator(".stages li").nth(1).wait_for()
     accessible(page)
     page.get_by_role("button", name="Stop").click()
-    page.wait_for_selector("text=Stopped", timeout=120_000)
+    page.wait_for_selector("text=Stopped")
     page.get_by_role("button", name="Go on").click()
-    page.wait_for_selector("text=Read the report", timeout=300_000)
+    page.wait_for_selector("text=Read the report")
     accessible(page)
     page.get_by_role("link", name="Read the report").click()
     report = page.frame_locator("iframe")
