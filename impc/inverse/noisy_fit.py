@@ -184,7 +184,8 @@ def _exact(free: Fitted, evaluations: int) -> Estimate | None:
         other = reduced_from(behind)
         if not other.explained:
             return None
-        problem, weights, evaluations = other.problem, other.stage_weights, other.evaluations
+        problem, weights = other.problem, other.stage_weights
+        evaluations += other.evaluations
     return _finish(free, problem, weights, evaluations=evaluations, converged=True)
 
 

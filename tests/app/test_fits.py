@@ -13,12 +13,12 @@ import pytest
 from impc.app.fits import Fit, Fits, State
 from impc.jit import cache_home
 from impc.reporting.writer import owned
-from tests.app.serving import ROOT, Client, serving
+from tests.app.serving import PATIENCE, ROOT, Client, serving
 
 
-def until(wanted: Callable[[], object], seconds: float = 300.0) -> None:
+def until(wanted: Callable[[], object]) -> None:
     """Wait; the time is only a limit for a test that hangs."""
-    end = time.monotonic() + seconds
+    end = time.monotonic() + PATIENCE
     while not wanted():
         assert time.monotonic() < end
         time.sleep(0.05)
@@ -82,7 +82,7 @@ def test_no_fit_is_left_behind(how: signal.Signals, tmp_path: Path) -> None:
         assert fits
         client.process.send_signal(how)
         client.process.wait(30)
-        _, alive = psutil.wait_procs(fits, timeout=120)
+        _, alive = psutil.wait_procs(fits, timeout=PATIENCE)
         assert not alive
     with serving(folder) as client:
         assert "Go on" in client.get("fit", f="practice").text
